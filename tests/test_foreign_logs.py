@@ -20,7 +20,7 @@ from test_readers import LASER, SMALL, Messages, bag, drive
 from perception.errors import LogError
 from perception.places.following import follow
 from perception.places.log_checks import refuse_mixed
-from perception.places.odometers import is_missing, lag_of, with_lag
+from perception.places.odometers import is_missing, lag_of, unmeasured, with_lag
 from perception.readers.bag_frames import RecordedTrack, flat_pose
 from perception.readers.bag_geometry import Mount, believed
 from perception.readers.echoes import LaserOptions, interpret_log
@@ -325,6 +325,19 @@ def test_gap_in_the_odometry_is_named(tmp_path: Path) -> None:
         lambda m: [one for one in ahead(m) if one[0] == "/scan" or not 20 < one[1] < 40],
     )
     assert "The odometry has 1 gap: for 20.0 s from 20.0 s on" in notes(read_log(path))
+
+
+def test_track_follows_the_scans_in_a_gap_of_the_odometry() -> None:
+    scans = hall(every=0.5)[:120]
+    times = np.array([scan.time for scan in scans])
+    poses = np.array([scan.odometry for scan in scans])
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    turning = int(np.abs(np.diff(poses[:, 2])).argmax())
+    kept = np.abs(np.arange(len(scans)) - turning) > 8
+    gap = with_lag(RobotLog(scans, odometer=(times[kept], poses[kept])), 0.0)
+    assert len(unmeasured(gap)) == 18
+    off = follow(gap).poses - follow(RobotLog(scans)).poses
+    assert np.hypot(*off[:, :2].T).max() < 0.3
 
 
 def test_late_scans_are_found_by_their_turns() -> None:

@@ -259,10 +259,11 @@ def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
     Without odometry, there is none.
     """
     found: list[tuple[int, float]] = []
+    unknown = odometers.unmeasured(log).union(track.cuts)
     for i in range(1, len(log)) if not odometers.is_missing(log) else ():
         measured = displacement_between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
         off = wrapped(float(track.poses[i, 2] - track.poses[i - 1, 2]) - measured)
-        is_matched = track.shares[i] >= following.POOR and i not in track.cuts
+        is_matched = track.shares[i] >= following.POOR and i not in unknown
         if abs(off) > following.TURNED and is_matched:
             found.append((i, off))
     return found

@@ -315,13 +315,13 @@ def _beams_of(log: RobotLog) -> float:
 
 def _overriding(log: RobotLog, track: Track) -> float:
     """The share of the steps in which matching contradicts the odometry."""
-    count = 0
+    count, unknown = 0, odometers.unmeasured(log).union(track.cuts)
     for i in range(1, len(log)):
         measured = displacement_between(log.scans[i - 1].odometry, log.scans[i].odometry)
         seen = displacement_between(track.pose(i - 1), track.pose(i))
         off = np.array([*np.subtract(seen[:2], measured[:2]), wrapped(seen[2] - measured[2])])
         spread = np.diag(odometer_covariance(measured))
-        count += i not in track.cuts and float((off**2 / spread).sum()) > CONTRADICTS
+        count += i not in unknown and float((off**2 / spread).sum()) > CONTRADICTS
     return count / max(len(log) - 1, 1)
 
 

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from perception.places.track import Array, Track, wrapped
-from perception.readers.bags import TimedPoses, sources_of
+from perception.readers.bags import TimedPoses, gaps_of, sources_of
 from perception.readers.echoes import moving
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.odometry import Pose, displacement_between
@@ -207,11 +207,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
     """
     # At a cut after a long step, the odometer jumped. After none, it stood still while the robot
     # moved. At the end of a usual step, only the scans show that the robot was carried.
-    steps = {
-        cut: displacement_between(log.scans[cut - 1].odometry, log.scans[cut].odometry)
-        for cut in track.cuts
-    }
-    far = {cut: math.hypot(x, y) for cut, (x, y, _) in steps.items()}
+    far = dict(enumerate(_far(log, 1).tolist(), 1))
     jumps = [cut for cut in track.cuts if far[cut] > FAR / 2]
     still = [cut for cut in track.cuts if far[cut] <= STILL and cut not in track.breaks]
     notes = []
@@ -231,11 +227,10 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
         )
     if gaps := _gaps(log, track):
         first = gaps[0]
-        step = math.dist(log.scans[first - 1].odometry[:2], log.scans[first].odometry[:2])
         notes.append(
             f"The scans show nothing of what was seen before, {times(len(gaps))}, while the "
-            f"odometry goes on: by {step:.1f} m before scan {first} ({_where(log, first)}). The "
-            "odometry alone connects the parts. If scans are missing there, or the robot was "
+            f"odometry goes on: by {far[first]:.1f} m before scan {first} ({_where(log, first)}). "
+            "The odometry alone connects the parts. If scans are missing there, or the robot was "
             "carried, cut the log there, and map each part."
         )
     if turned:
@@ -266,12 +261,8 @@ def _describe_jumps(log: RobotLog, jumps: list[int], far: Mapping[int, float]) -
 
 def _gaps(log: RobotLog, track: Track) -> list[int]:
     """Find the scans after a long step that match nothing, though the odometry is trusted."""
-    far = _far(log, 1) if len(log) > 1 else np.zeros(0)
-    return [
-        i
-        for i in (np.flatnonzero(far > FAR) + 1).tolist()
-        if track.shares[i] < UNMATCHED and i not in track.cuts and i not in track.breaks
-    ]
+    far = _targets(_far(log, 1) > FAR).difference(track.cuts)
+    return sorted(i for i in far if track.shares[i] < UNMATCHED)
 
 
 def times(count: int) -> str:
@@ -293,7 +284,7 @@ class Doubt(Enum):
     SEAM = "a drive seems to begin: the step is unknown unless the scan matches at its end"
     DOUBTFUL = "the step is long: it is a jump if the scan matches only near the previous pose"
     UNKNOWN = "the odometer jumped, or missed a motion"
-    MISSING = "the odometer stands still in most steps, so it does not show that the robot stands"
+    MISSING = "the odometer does not show this step: it has a gap, or stands still in most steps"
     CARRIED = "the robot was carried while nothing was logged"
 
 
@@ -345,6 +336,7 @@ def doubts_of(log: RobotLog) -> tuple[dict[int, Doubt], list[tuple[int, int]]]:
     # The last doubt about a step counts.
     for scans, doubt in (
         (_targets(stands_still(log)) if is_missing(log) else (), Doubt.MISSING),
+        (unmeasured(log), Doubt.MISSING),
         (_targets(doubtful), Doubt.DOUBTFUL),
         (restarted.union(scan for scan, _ in seams_of(log)), Doubt.SEAM),
         (_targets(jumped) | moved, Doubt.UNKNOWN),
@@ -352,6 +344,16 @@ def doubts_of(log: RobotLog) -> tuple[dict[int, Doubt], list[tuple[int, int]]]:
     ):
         doubts |= dict.fromkeys(scans, doubt)
     return doubts, still
+
+
+def unmeasured(log: RobotLog) -> set[int]:
+    """Find the scans that come in a gap of the odometry, or next after it."""
+    if log.odometer is None or any(scan.time is None for scan in log.scans):
+        return set()
+    times, at = log.odometer[0], [scan.time or 0.0 for scan in log.scans]
+    gaps = [(times[i], times[i + 1]) for i in gaps_of(*log.odometer)]
+    steps = enumerate(pairwise(at), 1)
+    return {k for k, (t, then) in steps if any(t < end and then > begin for begin, end in gaps)}
 
 
 def _targets(steps: NDArray[np.bool_]) -> set[int]:
@@ -500,14 +502,12 @@ LEAST_CHANGE, CLOSER_TURNED, CLOSER_WIDENED = 10, 0.75, 0.85
 def disagreement(log: RobotLog, track: Track) -> str | None:
     """Describe how scan matching and odometry differ, likely causes, and options that correct it.
 
-    Returns None if scans and odometry agree. Stretches across a cut of the track, where the motion
-    is unknown, are ignored. If the odometer hardly moved, only lengths are compared.
+    Returns None if scans and odometry agree. Stretches across a cut of the track or a gap of the
+    odometry are ignored. If the odometer hardly moved, only lengths are compared.
     """
     # 1. Compare the motions along stretches: their lengths, directions, ends and turns.
-    odometry = log.odometry
-    stretches = [
-        (i, j) for i, j in _stretches(odometry) if not any(i < cut <= j for cut in track.cuts)
-    ]
+    odometry, unknown = log.odometry, unmeasured(log).union(track.cuts)
+    stretches = [(i, j) for i, j in _stretches(odometry) if unknown.isdisjoint(range(i + 1, j + 1))]
     measured, seen = (
         np.array([displacement_between(way[i], way[j]) for i, j in stretches]).reshape(-1, 3)
         for way in (odometry, track.poses)

@@ -49,7 +49,7 @@ from ssh_abduction.data.odometry import Pose, moved
 from ssh_abduction.data.words import counted, first_few
 
 # Seconds beyond the ends of the odometry at which a scan still gets a pose.
-BESIDE = 1.0
+BESIDE = 0.2
 # Clocks that differ by more than this many seconds are different clocks.
 SAME_CLOCK = 1.0
 # Clocks are compared at intervals of at least COMPARED seconds, at most TIMES times in a drive, by
@@ -312,29 +312,32 @@ def read(
         sources.append(f"Corrected poses come from the transforms above {odom}.")
     corrections = [TimedPoses.of(track, by_stamp) for track in above]
     poses = TimedPoses.of(odometer, by_stamp)
-    notes += _gaps(poses)
+    notes += _describe_gaps(poses)
     where = _ScanPoses(poses, corrections, mounts, by_stamp, told.fov)
     items = _scans(bag, set(scans), where, damaged, survey.repeated)
     odometry = poses.times, poses.poses
     return SurveyedLog(bag.format, tuple(notes), items, assumed, tuple(sources), odometry)
 
 
-def _gaps(poses: TimedPoses) -> list[str]:
+def gaps_of(times: Array, poses: Array) -> list[int]:
+    """Find the poses after which no other came for a while in which the robot moved."""
+    pauses = np.diff(times)
+    moves = np.abs(np.diff(poses, axis=0)).max(axis=1)
+    usual = float(np.median(pauses)) if len(pauses) else 0.0
+    return np.flatnonzero((pauses > max(GAP, LONGER * usual)) & (moves > UNSEEN)).tolist()
+
+
+def _describe_gaps(poses: TimedPoses) -> list[str]:
     """Make a note if no odometry came for a while in which the robot moved; otherwise none."""
-    pauses = np.diff(poses.times)
-    if not len(pauses):
+    times = poses.times
+    if not (found := gaps_of(times, poses.poses)):
         return []
-    moves = np.abs(np.diff(poses.poses, axis=0)).max(axis=1)
-    found = np.flatnonzero(
-        (pauses > max(GAP, LONGER * float(np.median(pauses)))) & (moves > UNSEEN)
-    )
-    if not len(found):
-        return []
-    longest = int(found[pauses[found].argmax()])
+    longest = max(found, key=lambda k: times[k + 1] - times[k])
     return [
-        f"The odometry has {counted(len(found), 'gaps')}: for {pauses[longest]:.1f} s from "
-        f"{poses.times[longest]:.1f} s on at most. Poses in between are interpolated, so they may "
-        "be wrong. Record the odometry without a break, or cut the log there."
+        f"The odometry has {counted(len(found), 'gaps')}: for "
+        f"{times[longest + 1] - times[longest]:.1f} s from {times[longest]:.1f} s on at most. "
+        "There, the track rests on the scans alone. Record the odometry without a break, or cut "
+        "the log there."
     ]
 
 
