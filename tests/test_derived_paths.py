@@ -212,6 +212,18 @@ def test_doors_cut_off_rooms_but_do_not_end_a_corridor() -> None:
     assert "15 m, 2.0 m wide" in text
 
 
+@pytest.mark.parametrize("way", [1, -1])
+@pytest.mark.parametrize(("width", "expected"), [(2.6, {(0, 1, 2, 3)}), (3.4, {(0, 1), (2, 3)})])
+def test_a_door_in_an_end_wall_parts_two_corridors_of_one_path(
+    width: float, expected: set[tuple[int, ...]], way: int
+) -> None:
+    """The door is 0.9 m wide. Its end wall is more than twice as long in a corridor of 3.4 m."""
+    found = with_building(*drive(LINE, range(4)[::way], width, doors=[(1, 2)]))
+    assert orders(found) == {(0, 1, 2, 3)}
+    assert {min(c.order, c.order[::-1]) for c in found.corridors} == expected
+    assert sum(len(c.doors) for c in found.corridors) == 2 - len(expected)
+
+
 def test_a_closet_is_no_corridor_though_it_is_long_and_slim() -> None:
     """Two doors lead from it to one room: the robot goes in by one, and out by the other."""
     points = [*LINE, (0.0, 20.0), (15.0, 20.0)]

@@ -1,7 +1,8 @@
 """Find the doors, rooms and corridors of a plan.
 
 Rooms are what doors cut off. Corridors are the long and slim parts of paths. A fire door across a
-corridor parts rooms, but neither the path nor the corridor.
+corridor parts rooms, but neither the path nor the corridor. A door in an end wall, which is much
+wider than the door, parts two corridors of one path.
 
 The free space of a room is what lies between the walls on both sides of the edges there.
 
@@ -116,6 +117,8 @@ LONG, SLIM, STRAIGHT = 6.0, 3.0, 0.8
 # A part of a path between two doors is a room if it is shorter than SHORT metres, or than SQUARE
 # widths; at an end of the path, than END widths. Its width is exceeded on WIDEST per cent of it.
 SHORT, SQUARE, END, WIDEST = 2.0, 1.3, 2.0, 30
+# A corridor ends at a door that takes less than LEAF of its width: it has an end wall there.
+LEAF = 1 / 3
 # The robot never drove through some openings. Leave out those of them that are less than BESIDE
 # metres from an opening that it drove through.
 BESIDE = 1.2
@@ -253,12 +256,23 @@ def _is_closet(corridor: Corridor, own: set[int], doors: Sequence[MapDoor]) -> b
 
 
 def long_parts(way: PairedWay) -> Iterator[Part]:
-    """Yield the parts of a way that are corridors: between rooms that it crosses."""
+    """Yield the parts of a way that are corridors, between rooms that it crosses and end walls."""
     stops = sorted({p.at for p in way.passages if p.door is not None})
     parts = pairwise([0, *stops, len(way.line) - 1])
     for is_room, run in groupby(parts, key=lambda part: _is_room(way, part, SQUARE)):
         if not is_room and (whole := _corridor(way, [*run])) is not None:
-            yield whole
+            yield from pairwise([whole[0], *_end_walls(way, *whole), whole[1]])
+
+
+def _end_walls(way: PairedWay, begin: int, end: int) -> Iterator[int]:
+    """Yield the doors inside a part of a way that lead through end walls."""
+    inside = (p for p in way.passages if p.door is not None and begin < p.at < end)
+    doors = dict(sorted((p.at, p.width) for p in inside))  # the widest one at each point
+    stops = [begin, *doors, end]
+    for (at, width), before, after in zip(doors.items(), stops[:-2], stops[2:], strict=True):
+        sides = way.widths[before : at + 1], way.widths[at : after + 1]
+        if width < LEAF * min(map(np.median, sides)):
+            yield at
 
 
 def _corridor(way: PairedWay, parts: list[Part]) -> Part | None:

@@ -207,16 +207,8 @@ class Indoors(SparseData):
 
         def corridor(c: Corridor) -> Corridor:
             openings = tuple(replace(o, place=one(o.place), to=one(o.to)) for o in c.openings)
-            left, right, around = (places(side) for side in (c.left, c.right, c.around))
-            return replace(
-                c,
-                path=path[c.path],
-                order=places(c.order),
-                openings=openings,
-                left=left,
-                right=right,
-                around=around,
-            )
+            renumbered = {name: places(getattr(c, name)) for name in ("order", *SIDES)}
+            return replace(c, path=path[c.path], openings=openings, **renumbered)
 
         return Indoors(
             tuple(map(corridor, self.corridors)),
