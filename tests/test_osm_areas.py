@@ -135,6 +135,19 @@ def test_rooms_are_in_wings_and_wings_in_the_building(house: SSHMap) -> None:
     assert all(parents[side] == whole for side in sides)
 
 
+def test_the_area_of_a_room_leaves_out_the_walls_that_it_leads_around() -> None:
+    """Corridors of 2 m lead around two blocks, as the strokes of an 8."""
+    points = [(10.0 * x, 8.0 * y) for y in range(2) for x in range(3)]
+    found = with_building(*drive(points, [0, 1, 2, 5, 4, 3, 0, 1, 4]))
+    loaded_areas = loaded(export_map(found, "osm"))
+    (ring,) = (loaded_areas.rings[n] for n in loaded_areas.graph)
+    corners = np.array([[z.real, z.imag] for z in ring])
+    inside = points_in_poly([(0, 4), (5, 8), (10, 4), (15, 8), (20, 4), (5, 4), (15, 4)], corners)
+    assert inside.tolist() == [True] * 5 + [False] * 2
+    area = abs(sum((a.conjugate() * b).imag for a, b in itertools.pairwise(ring))) / 2
+    assert area == pytest.approx(2 * 22 * 2 + 3 * 6 * 2, abs=4)
+
+
 def test_areas_contain_their_places_and_doors_their_middle(house: SSHMap) -> None:
     text = export_map(house, "osm")
     found = loaded(text)

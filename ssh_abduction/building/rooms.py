@@ -22,6 +22,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial.distance import cdist
 
 from perception.places.passages import DOOR, STEP, WIDE, directions, resampled, to_the_left
 from ssh_abduction.building.edges import Array, FloorPlan, Gap, PlanEdge, Spot, walls_beside
@@ -123,6 +124,7 @@ LEAF = 1 / 3
 # metres from an opening that it drove through.
 BESIDE = 1.2
 SPIKE = 0.6  # metres: the least width of a room
+HOLE = 2.0  # square metres: smaller holes in free space are furniture
 Part = tuple[int, int]  # the first and the last point of a part of a way
 
 
@@ -333,18 +335,37 @@ def spaces_of(plan: FloorPlan, room: dict[int, int]) -> dict[int, RoomSpace]:
 
 def outlines_of(spaces: Mapping[int, RoomSpace]) -> dict[int, tuple[Point, ...]]:
     """Find the polygon of the free space of each room."""
-    from skimage.measure import approximate_polygon, find_contours
-
     found = {}
     for number, space in spaces.items():
-        free, corner = space.free, space.corner
-        rings = find_contours(np.pad(free, 1).astype(float), 0.5)
-        if rings:
-            ring = approximate_polygon(max(rings, key=len), 1.5)[:-1]
-            found[number] = tuple(
-                (round(float(x), 2), round(float(y), 2)) for x, y in corner + (ring - 1) * GRID
-            )
+        if space.free.any():
+            ring = space.corner + (_ring(space.free) - 1) * GRID
+            found[number] = tuple((round(float(x), 2), round(float(y), 2)) for x, y in ring)
     return found
+
+
+def _ring(free: NDArray[np.bool_]) -> Array:
+    """The ring, (n, 2) cells, around the largest free part, with a line to each hole and back.
+
+    The cells begin at 1. A hole is walls that the robot drove around.
+    """
+    from skimage.measure import approximate_polygon, find_contours
+
+    parts = ndimage.label(free)[0]
+    part = np.pad(parts == np.bincount(parts[free]).argmax(), 1).astype(float)
+    chain, *rings = sorted(find_contours(part, 0.5), key=_area)  # Holes have a positive area.
+    chains, holes = [chain], [ring for ring in rings if _area(ring) > HOLE / GRID**2]
+    while holes:
+        far = [(cdist(c, hole), k, n) for k, c in enumerate(chains) for n, hole in enumerate(holes)]
+        between, k, n = min(far, key=lambda one: float(one[0].min()))
+        i, j = np.unravel_index(between.argmin(), between.shape)
+        hole, chain = holes.pop(n), chains[k]
+        chains[k : k + 1] = chain[: i + 1], np.concatenate([hole[j:], hole[1 : j + 1]]), chain[i:]
+    return np.concatenate([approximate_polygon(chain, 1.5) for chain in chains])[:-1]
+
+
+def _area(ring: Array) -> float:
+    """The area of a ring, (n, 2), whose last corner is its first: positive counterclockwise."""
+    return float((ring[:-1, 0] * ring[1:, 1] - ring[1:, 0] * ring[:-1, 1]).sum() / 2)
 
 
 ONWARD = math.radians(45)  # An edge that leaves within this angle goes on straight.

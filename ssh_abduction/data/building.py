@@ -74,6 +74,7 @@ class MapRoom(SparseData):
         doors: The ids of its doors.
         corridors: The ids of the corridors that have places in it.
         outline: The polygon of its free space between the walls that were seen; empty if none were.
+            A line without width leads to each block of walls in it, around it, and back.
     """
 
     id: int
