@@ -14,6 +14,7 @@ import webbrowser
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -239,12 +240,8 @@ def way_in_words(
 
 def _names(words: list[str] | None, given: Collection[str]) -> list[str]:
     """Split words at commas, to list what to avoid. Names that a person gave may have commas."""
-    return [
-        name
-        for word in words or ()
-        for name in ([word] if word in given else word.split(","))
-        if name
-    ]
+    parts = ([word] if word in given else word.split(",") for word in words or ())
+    return [*filter(None, chain.from_iterable(parts))]
 
 
 @verb()

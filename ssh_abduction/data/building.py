@@ -6,7 +6,7 @@ They follow from the finished map of a robot's log, as `ssh_abduction.building` 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from ssh_abduction.data.schema import FieldReader, Shape, SparseData
@@ -208,20 +208,17 @@ class Indoors(SparseData):
 
         def corridor(c: Corridor) -> Corridor:
             openings = tuple(replace(o, place=one(o.place), to=one(o.to)) for o in c.openings)
-            renumbered = {name: places(getattr(c, name)) for name in ("order", *SIDES)}
-            return replace(c, path=path[c.path], openings=openings, **renumbered)
+            new: dict[str, Any] = {name: places(getattr(c, name)) for name in ("order", *SIDES)}
+            return replace(c, path=path[c.path], openings=openings, **new)
+
+        def door(d: MapDoor) -> MapDoor:
+            dstates = tuple(sorted(dstate[s] for s in d.dstates))
+            return replace(d, places=places(d.places), dstates=dstates)
 
         return Indoors(
             tuple(map(corridor, self.corridors)),
             tuple(replace(room, places=tuple(sorted(places(room.places)))) for room in self.rooms),
-            tuple(
-                replace(
-                    door,
-                    places=places(door.places),
-                    dstates=tuple(sorted(dstate[s] for s in door.dstates)),
-                )
-                for door in self.doors
-            ),
+            tuple(map(door, self.doors)),
             tuple(tuple(sorted(places(some))) for some in self.junctions),
             self.notes,
         )
@@ -233,37 +230,23 @@ SIDES = ("left", "right", "around")
 def read_building(read: FieldReader, value: Any, name: str) -> Indoors:
     """Read a building from the plain data of `Indoors.to_dict`. Raises MapError."""
     number, integer, integers = read.number, read.integer, read.integers
-    maybe: Shape[Any] = read.maybe(integer)
     point: Shape[Any] = read.several(number, "two numbers", 2)
     line: Shape[Any] = read.several(point, "a list of points")
+    shapes: dict[str, Shape[Any]] = {
+        **dict.fromkeys(("id", "path"), integer),
+        **dict.fromkeys(("place", "door", "to"), read.maybe(integer)),
+        **dict.fromkeys(("length", "width", "metres"), number),
+        **dict.fromkeys(("line", "outline"), line),
+        **{"at": point, "side": read.one_of(SIDES[:2])},
+    }
 
-    def each(kind: type[Any], **shapes: Shape[Any]) -> Callable[[Any, str], Any]:
-        return read.several(lambda value, name: read.record(kind, value, name, **shapes), "a list")
+    def each(kind: type[Any], **more: Shape[Any]) -> Callable[[Any, str], Any]:
+        every = {f.name: (shapes | more).get(f.name, integers) for f in fields(kind)}
+        return read.several(lambda value, name: read.record(kind, value, name, **every), "a list")
 
-    opening = {"side": read.one_of(SIDES[:2]), "metres": number}
-    openings = each(WayOut, **opening, place=maybe, door=maybe, to=maybe)
-    sides = dict.fromkeys(SIDES, integers)
-    way = {"order": integers, "line": line, "length": number, "width": number}
-    found = read.record(
-        Indoors,
-        value,
-        name,
-        corridors=each(
-            Corridor, id=integer, path=integer, **way, doors=integers, openings=openings, **sides
-        ),
-        rooms=each(
-            MapRoom, id=integer, places=integers, doors=integers, corridors=integers, outline=line
-        ),
-        doors=each(
-            MapDoor,
-            id=integer,
-            at=point,
-            width=number,
-            **dict.fromkeys(("places", "rooms", "dstates"), integers),
-        ),
-        junctions=read.several(integers, "a list"),
-        notes=read.several(read.text, "a list"),
-    )
+    own = {"corridors": each(Corridor, openings=each(WayOut)), "rooms": each(MapRoom)}
+    own |= {"doors": each(MapDoor), "junctions": read.several(integers, "a list")}
+    found = read.record(Indoors, value, name, notes=read.several(read.text, "a list"), **own)
     for kind in ("corridors", "rooms", "doors"):
         ids = [thing.id for thing in getattr(found, kind)]
         if ids != list(range(len(ids))):

@@ -20,8 +20,10 @@ ends. The later version looks the action up in the `actions` of the map, and tak
 
 from __future__ import annotations
 
+import cmath
 import math
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import networkx as nx
@@ -43,7 +45,8 @@ from ssh_abduction.output.roads import DIGITS, NO_PLACES, Road, Roads, Stop, und
 FORMATS = ("nav2", "tmap2", "osm", "graphml", "dot", "svg", "networkx-json")
 FOR_NAVIGATION = ("nav2", "tmap2")  # these need positions
 LEVELS = ("places", "dstates")
-ACTION = "NavigateToPose"
+# What all topological maps of LCAS's topological_navigation, their nodes and edges have in common.
+TMAP2 = Path(__file__).with_name("tmap2.yaml")
 # Tolerances of goals in metres and radians, from the program's own examples. The robot has to reach
 # the heading of a dstate; at a place, any heading will do.
 NEAR, FACING = 0.3, {"dstates": 0.1, "places": 6.28}
@@ -240,109 +243,62 @@ def tmap2(roads: Roads, name: str, frame: str) -> str:
     if roads.level == "places":  # programs go to a place by its name
         own = {stop.id: stop.name for stop in roads.stops if stop.name is not None}
         names |= {number: name for number, name in own.items() if name not in names.values()}
-    leaving: dict[int, list[Road]] = {stop.id: [] for stop in roads.stops}
+    same = yaml.safe_load(TMAP2.read_text(encoding="utf-8"))
+    edges: dict[int, list[dict[str, Any]]] = {stop.id: [] for stop in roads.stops}
     for road in roads.roads:
-        leaving[road.start].append(road)
-    # Edges name their action, which the map describes once.
+        edges[road.start].append({**same["edge"], **_edge(road, names)})
+    made = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
+    nodes = [
+        {
+            "meta": {"map": name, "node": names[stop.id], "pointset": name},
+            "node": {
+                **same["node"],
+                **_node(stop, FACING[roads.level]),
+                "name": names[stop.id],
+                "parent_frame": frame,
+                "edges": edges[stop.id],
+            },
+        }
+        for stop in roads.stops
+    ]
     data = {
-        "meta": {
-            "last_updated": datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S"),
-            "positions": "metres" if roads.metric else "layout",
-        },
-        "metric_map": name,
-        "name": name,
-        "pointset": name,
-        "transformation": {
-            "rotation": _rotation(0.0),
-            "translation": {"x": 0.0, "y": 0.0, "z": 0.0},
-            "child": "topo_map",
-            "parent": frame,
-        },
-        # The later version looks up the action of an edge here.
-        "actions": {
-            ACTION: {
-                "action_type": f"nav2_msgs.action.{ACTION}",
-                "action_server": "/navigate_to_pose",
-                "composable": False,
-                "action_goal_template": {
-                    "pose": {"header": {"frame_id": "${node.nav_frame}"}, "pose": "${node.pose}"}
-                },
-            }
-        },
-        "nodes": [
-            _node(stop, leaving[stop.id], names, name, frame, FACING[roads.level])
-            for stop in roads.stops
-        ],
+        **same["map"],
+        "meta": {"last_updated": made, "positions": "metres" if roads.metric else "layout"},
+        **dict.fromkeys(("metric_map", "name", "pointset"), name),
+        "transformation": {**same["map"]["transformation"], "parent": frame},
+        "nodes": nodes,
     }
     text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=2**16)
     return text
 
 
-def _node(
-    stop: Stop, leaving: list[Road], names: dict[int, str], pointset: str, frame: str, facing: float
-) -> dict[str, Any]:
-    """Make a node with its goal tolerances, the octagon around it, and the edges from it."""
-    corners = [math.tau * (i + 0.5) / 8 for i in range(8)]
+def _node(stop: Stop, facing: float) -> dict[str, Any]:
+    """Make the pose of a node, its goal tolerances, and the octagon around it."""
+    properties = {"xy_goal_tolerance": NEAR, "yaw_goal_tolerance": facing, **stop.properties}
+    octagon = [cmath.rect(RADIUS, math.tau * (i + 0.5) / 8) for i in range(8)]
+    position = {"x": _rounded(stop.x), "y": _rounded(stop.y), "z": 0.0}
     return {
-        "meta": {"map": pointset, "node": names[stop.id], "pointset": pointset},
-        "node": {
-            "name": names[stop.id],
-            "parent_frame": frame,
-            "localise_by_topic": "",
-            "pose": {
-                "position": {"x": _rounded(stop.x), "y": _rounded(stop.y), "z": 0.0},
-                "orientation": _rotation(stop.heading),
-            },
-            "properties": {
-                "xy_goal_tolerance": NEAR,
-                "yaw_goal_tolerance": facing,
-                **stop.properties,
-                **only_known(place_name=stop.name, floor=stop.floor),
-            },
-            "restrictions_planning": "True",
-            "restrictions_runtime": "True",
-            "verts": [
-                {"x": _rounded(RADIUS * math.cos(a)), "y": _rounded(RADIUS * math.sin(a))}
-                for a in corners
-            ],
-            "edges": [_edge(road, names) for road in leaving],
-        },
+        "pose": {"position": position, "orientation": _rotation(stop.heading)},
+        "properties": {**properties, **only_known(place_name=stop.name, floor=stop.floor)},
+        "verts": [{"x": _rounded(z.real), "y": _rounded(z.imag)} for z in octagon],
     }
 
 
 def _edge(road: Road, names: dict[int, str]) -> dict[str, Any]:
-    """Make an edge that both versions of the program read."""
+    """Make what is special to an edge."""
+    own = only_known(robot_action=road.action, path_name=road.name)
+    measured = dict.fromkeys(("weight", "length"), _rounded(road.length))
     return {
         "edge_id": f"{names[road.start]}_{names[road.end]}",
         "node": names[road.end],
-        "action": ACTION,
-        "action_type": f"nav2_msgs/action/{ACTION}",
-        "config": [],
-        "fail_policy": "fail",
-        "fluid_navigation": True,
-        "goal": {
-            "target_pose": {"header": {"frame_id": "$node.parent_frame"}, "pose": "$node.pose"}
-        },
-        "recovery_behaviours_config": "",
-        "restrictions_planning": "True",
-        "restrictions_runtime": "True",
-        "properties": {
-            "weight": _rounded(road.length),
-            "length": _rounded(road.length),
-            "travelled": road.action is not None,
-            **only_known(robot_action=road.action, path_name=road.name),
-        },
+        "properties": {**measured, "travelled": road.action is not None, **own},
     }
 
 
 def _rotation(heading: float) -> dict[str, float]:
     """Convert a heading in radians to a quaternion."""
-    return {
-        "w": _rounded(math.cos(heading / 2), 6),
-        "x": 0.0,
-        "y": 0.0,
-        "z": _rounded(math.sin(heading / 2), 6),
-    }
+    half = cmath.rect(1.0, heading / 2)
+    return {"w": _rounded(half.real, 6), "x": 0.0, "y": 0.0, "z": _rounded(half.imag, 6)}
 
 
 def _rounded(number: float, digits: int = DIGITS) -> float:
@@ -351,7 +307,13 @@ def _rounded(number: float, digits: int = DIGITS) -> float:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes numbers with a decimal point and no exponent, because PyYAML reads 4e-06 as text."""
+    """Writes numbers with a decimal point and no exponent, because PyYAML reads 4e-06 as text.
+
+    What edges have in common is written for each.
+    """
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
 
 
 _Dumper.add_multi_representer(str, _Dumper.represent_str)  # also texts of numpy
