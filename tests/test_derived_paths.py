@@ -25,6 +25,7 @@ from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.building.derive import buildings_of, with_building
 from ssh_abduction.building.directions import RouteCourse, directions_to
 from ssh_abduction.building.edges import LEG, PlanEdge, _corners
+from ssh_abduction.building.rooms import GRID, drawn, strips_of
 from ssh_abduction.building.straight_paths import PRICE, best_pairings, chains_of, sides_of
 from ssh_abduction.building.telling import told
 from ssh_abduction.checker.buildings import faults_of_corridors, faults_of_paths
@@ -328,6 +329,16 @@ def test_parts_that_share_wide_free_space_are_one_room() -> None:
         assert found.building
         assert {p: found.building.room_of(p) for p in rooms} == rooms
         assert not [c for c in found.corridors if 5 in c.order or 0 in c.order] or width == 1.0
+
+
+def test_what_lies_between_views_around_a_bend_is_not_free() -> None:
+    """The robot turns right within 0.5 m. Ahead it saw 4 m far to both sides of the bend."""
+    course = np.array([(STEP * k, 0.0) for k in range(9)] + [(2.0, -STEP * k) for k in range(1, 9)])
+    edge = PlanEdge((0, 1), course, (0,), np.array([(4.0, 0.5)] * 17))
+    free, corner = drawn([*strips_of(edge, 0, 16, 1.45)], np.array([(7.0, 5.0)]))
+    seen = {(1.0, 3.0): True, (2.5, 0.3): True, (5.0, -1.5): True, (4.4, 2.4): False}
+    for point, is_free in seen.items():
+        assert free[tuple(np.rint((point - corner) / GRID).astype(int))] == is_free
 
 
 def test_outlines_of_rooms_end_at_their_doors() -> None:

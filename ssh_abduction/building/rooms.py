@@ -36,13 +36,20 @@ GRID = 0.1  # metres: a cell in which free space is drawn
 BODY = 0.3
 
 
-def strips_of(edge: PlanEdge, begin: int, stop: int) -> Iterator[Array]:
-    """Yield the corners, (4, 2) metres, of the free space between any two points of a course."""
-    left = to_the_left(edge.course)
-    wide = ndimage.median_filter(edge.widths, (3, 1))
-    sides = edge.course + wide[:, [0]] * left, edge.course - wide[:, [1]] * left
+def strips_of(edge: PlanEdge, begin: int, stop: int, most: float = math.inf) -> Iterator[Array]:
+    """Yield the corners, (4, 2) metres, of the free space between any two points of a course.
+
+    Where the course bends, walls may stand between two views to one side. If these part by more
+    than `most` metres, only what is nearer counts.
+    """
+    left, wide = to_the_left(edge.course), ndimage.median_filter(edge.widths, (3, 1))
+    reach = [sign * wide[:, [j]] * left for j, sign in enumerate((1, -1))]
+    ends = [np.hypot(*np.diff(edge.course + off, axis=0).T) for off in reach]
     for k in range(begin, stop):
-        corners = np.array([sides[0][k], sides[0][k + 1], sides[1][k + 1], sides[1][k]])
+        shares = (min(1.0, most / max(far[k], STEP / 2)) for far in ends)
+        seen = (share * off[k : k + 2] for share, off in zip(shares, reach, strict=True))
+        one, other = (edge.course[k : k + 2] + off for off in seen)
+        corners = np.concatenate([one, other[::-1]])
         if np.isfinite(corners).all():
             yield corners
 
@@ -149,7 +156,7 @@ def _numbered(graph: nx.Graph) -> dict[int, int]:
 
 def _shared(plan: FloorPlan, room: dict[int, int]) -> Iterator[tuple[int, int]]:
     """Yield a place of each of two rooms that share free space which is wider than a door."""
-    strips, spot = strips_of_rooms(plan, room), {k: p for p, k in room.items()}
+    strips, spot = strips_of_rooms(plan, room, DOOR), {k: p for p, k in room.items()}
     every = [strip for some in strips.values() for strip in some]
     free = {k: drawn(some, *every)[0] for k, some in strips.items()}
     for k, other in combinations(free, 2):
@@ -161,13 +168,18 @@ def _shared(plan: FloorPlan, room: dict[int, int]) -> Iterator[tuple[int, int]]:
             yield p, q
 
 
-def strips_of_rooms(plan: FloorPlan, room: dict[int, int]) -> dict[int, list[Array]]:
-    """Find the strips of free space along the ways of each room. Edges are cut at their doors."""
+def strips_of_rooms(
+    plan: FloorPlan, room: dict[int, int], most: float = math.inf
+) -> dict[int, list[Array]]:
+    """Find the strips of free space along the ways of each room. Edges are cut at their doors.
+
+    `most` is as in `strips_of`.
+    """
     strips: dict[int, list[Array]] = {}
     for edge in plan.edges:
         stops = [0, *(gap.at for gap in edge.doors), len(edge.course) - 1]
         for end, begin, stop in ((edge.ends[0], *stops[:2]), (edge.ends[1], *stops[-2:])):
-            strips.setdefault(room[end], []).extend(strips_of(edge, begin, stop))
+            strips.setdefault(room[end], []).extend(strips_of(edge, begin, stop, most))
     return {k: some for k, some in strips.items() if some}
 
 
@@ -268,12 +280,10 @@ def long_parts(way: PairedWay) -> Iterator[Part]:
 
 def _end_walls(way: PairedWay, begin: int, end: int) -> Iterator[int]:
     """Yield the doors inside a part of a way that lead through end walls."""
-    inside = (p for p in way.passages if p.door is not None and begin < p.at < end)
-    doors = dict(sorted((p.at, p.width) for p in inside))  # the widest one at each point
-    stops = [begin, *doors, end]
-    for (at, width), before, after in zip(doors.items(), stops[:-2], stops[2:], strict=True):
+    doors = {p.at: p.width for p in way.passages if p.door is not None and begin < p.at < end}
+    for before, at, after in zip([begin, *doors], doors, [*doors, end][1:], strict=False):
         sides = way.widths[before : at + 1], way.widths[at : after + 1]
-        if width < LEAF * min(map(np.median, sides)):
+        if doors[at] < LEAF * min(map(np.median, sides)):
             yield at
 
 
@@ -335,12 +345,9 @@ def spaces_of(plan: FloorPlan, room: dict[int, int]) -> dict[int, RoomSpace]:
 
 def outlines_of(spaces: Mapping[int, RoomSpace]) -> dict[int, tuple[Point, ...]]:
     """Find the polygon of the free space of each room."""
-    found = {}
-    for number, space in spaces.items():
-        if space.free.any():
-            ring = space.corner + (_ring(space.free) - 1) * GRID
-            found[number] = tuple((round(float(x), 2), round(float(y), 2)) for x, y in ring)
-    return found
+    some = {k: space for k, space in spaces.items() if space.free.any()}
+    rings = {k: space.corner + (_ring(space.free) - 1) * GRID for k, space in some.items()}
+    return {k: tuple((x, y) for x, y in np.round(ring, 2).tolist()) for k, ring in rings.items()}
 
 
 def _ring(free: NDArray[np.bool_]) -> Array:
