@@ -735,17 +735,38 @@ def test_checker_accepts_derived_buildings_and_finds_faults() -> None:
     assert rules(found) == before
     street = next(path for path in found.paths if len(path.order) == 4)
     others = [path for path in found.paths if path != street]
+    places, corridor, building = street.order, found.corridors[0], found.building
+    assert building
     for path, why in (
         (replace(street, order=(0, 1, 0, 3)), "lists a place twice"),
         (replace(street, left=(0,)), "on it, left, right or around"),
         (replace(street, right=(99,)), "which the map does not have"),
+        (replace(street, order=places[2:] + places[:2]), f"place {places[0]} before place"),
+        (replace(street, order=places[::-1]), f"place {places[0]} before place {places[1]}"),
     ):
         wrong = replace(found, paths=(path, *others))
         assert any(why in message for message in faults_of_paths(wrong))
         assert any(why in message for message in rules(wrong))
-    assert found.building
-    corridor = replace(found.corridors[0], order=(0, 2))
-    shuffled = replace(found, building=replace(found.building, corridors=(corridor,)))
-    assert [*faults_of_corridors(shuffled)] == [f"Corridor 0 is no part of path {street.id}."]
-    doorless = replace(found, building=replace(found.building, doors=()))
-    assert any("no door between" in message for message in rules(doorless))
+    sides = {"left": corridor.right, "right": corridor.left}
+    room, door = building.rooms[0], building.doors[0]
+    assert building.rooms[1].places == (4,)
+    merged = replace(room, places=(*room.places, 4)), replace(building.rooms[1], places=())
+    for faulty, why in (
+        ({"corridors": (replace(corridor, order=(0, 2)),)}, f"is no part of path {street.id}"),
+        ({"corridors": (replace(corridor, **sides),)}, f"has other sides than path {street.id}"),
+        ({"corridors": (with_way_to(corridor, 99),)}, "way to place 99"),
+        ({"rooms": (replace(room, doors=(9,)), *building.rooms[1:])}, "has doors [9]"),
+        ({"rooms": (replace(room, places=(0,)), *building.rooms[1:])}, "with no door between"),
+        ({"rooms": (*merged, *building.rooms[2:])}, "Door 0 is in rooms"),
+        ({"doors": (replace(door, rooms=(0, 7)), *building.doors[1:])}, "has rooms [7]"),
+        ({"doors": ()}, "no door between"),
+        ({"junctions": ((0, 1),)}, "more than 1 m apart"),
+    ):
+        wrong = replace(found, building=replace(building, **faulty))
+        assert any(why in message for message in rules(wrong)), why
+
+
+def with_way_to(corridor: Corridor, place: int) -> Corridor:
+    """The same corridor, whose first way out leads to another place."""
+    first, *others = corridor.openings
+    return replace(corridor, openings=(replace(first, to=place), *others))

@@ -9,22 +9,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
+from itertools import combinations, pairwise, product
+from typing import Any
 
 from ssh_abduction.checker.reading import Found, Reading
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.building import Point
+from ssh_abduction.data.maps import MapPath, SSHMap
+
+NEAR = 1.0  # metres between two places of a junction, at most; courses are known as well
 
 
 def building_follows_from_map(m: Reading) -> Found:
     """Check the derived paths, and that rooms are what doors cut off."""
-    for message in (*faults_of_paths(m.map), *faults_of_corridors(m.map)):
-        yield [], message
+    for faults in (faults_of_paths, faults_of_corridors, faults_of_numbers):
+        for message in faults(m.map):
+            yield [], message
     yield from rooms_are_cut_off_by_doors(m)
 
 
 def faults_of_paths(ssh_map: SSHMap) -> Iterator[str]:
     """Yield what is wrong with the orders and sides of derived paths."""
-    places = set(ssh_map.places)
+    places, at = set(ssh_map.places), _positions(ssh_map)
     for path in ssh_map.paths:
         if path.sure is None:
             continue
@@ -37,18 +44,43 @@ def faults_of_paths(ssh_map: SSHMap) -> Iterator[str]:
             yield f"Path {path.id} has a place twice: on it, left, right or around."
         if not 0 <= path.sure <= 1:
             yield f"Path {path.id} has probability {path.sure}."
+        far = [(_along(path.line, at[p]), p) for p in path.order if p in at]
+        for ((before, spare), p), ((after, more), q) in pairwise(far):
+            if after + more < before - spare:
+                yield f"Path {path.id} comes to place {q} before place {p}."
 
 
 def faults_of_corridors(ssh_map: SSHMap) -> Iterator[str]:
-    """Yield what is wrong with corridors: each is a part of its path, in its order."""
-    orders = {path.id: list(path.order) for path in ssh_map.paths}
+    """Yield what is wrong with corridors: each is a part of its path, and has its sides."""
+    paths = {path.id: path for path in ssh_map.paths}
     for c in ssh_map.corridors:
-        order = orders.get(c.path, [])
-        begin = order.index(c.order[0]) if c.order and c.order[0] in order else 0
-        if list(c.order) != order[begin : begin + len(c.order)]:
+        path = paths.get(c.path, MapPath(c.path, ()))
+        begin = path.order.index(c.order[0]) if c.order and c.order[0] in path.order else 0
+        if c.order != path.order[begin : begin + len(c.order)]:
             yield f"Corridor {c.id} is no part of path {c.path}."
-        if unknown := {*c.doors} - {door.id for door in ssh_map.doors}:
-            yield f"Corridor {c.id} has doors {sorted(unknown)}, which the map does not have."
+        if (c.left, c.right, c.around) != (path.left, path.right, path.around):
+            yield f"Corridor {c.id} has other sides than path {c.path}."
+        for o in c.openings:
+            beside = path.left if o.side == "left" else path.right
+            if o.to not in {None, *path.order, *path.around, *beside}:
+                yield f"Corridor {c.id} has a way to place {o.to}, which is not on its {o.side}."
+
+
+def faults_of_numbers(ssh_map: SSHMap) -> Iterator[str]:
+    """Yield numbers of corridors, rooms and doors that the map lacks, and too wide junctions."""
+    kinds = ("corridors", "rooms", "doors")
+    things: dict[str, Sequence[Any]] = {kind: getattr(ssh_map, kind) for kind in kinds}
+    known = {kind: {thing.id for thing in some} for kind, some in things.items()}
+    for what, kind in product(things, things):
+        for thing in things[what]:
+            if unknown := {*getattr(thing, kind, ())} - known[kind]:
+                said = f"{what[:-1].capitalize()} {thing.id} has {kind} {sorted(unknown)}"
+                yield f"{said}, which the map does not have."
+    at = _positions(ssh_map)
+    for places in ssh_map.building.junctions if ssh_map.building else ():
+        for p, q in combinations(places, 2):
+            if not abs(at.get(p, -9e9) - at.get(q, 9e9)) <= NEAR + 1e-6:
+                yield f"Places {p} and {q} are one junction, but more than {NEAR:g} m apart."
 
 
 def rooms_are_cut_off_by_doors(m: Reading) -> Found:
@@ -59,6 +91,10 @@ def rooms_are_cut_off_by_doors(m: Reading) -> Found:
             if p in room_of:
                 yield [], f"Place {p} is in rooms {room_of[p]} and {room.id}."
             room_of[p] = room.id
+    for door in m.map.doors:
+        own = {room_of[p] for p in door.places if p in room_of}
+        if not own <= {*door.rooms} or (len(door.places) > 1 and own != {*door.rooms}):
+            yield [], f"Door {door.id} is in rooms {door.rooms}, but its places in {sorted(own)}."
     for t, action in enumerate(m.trace.actions if m.map.rooms else ()):
         if action.kind != "travel":
             continue
@@ -68,3 +104,25 @@ def rooms_are_cut_off_by_doors(m: Reading) -> Found:
         if len(rooms) == 2 and not any(rooms & {*door.rooms} for door in passed):
             why = f"Places {here.place} and {there.place} are in two rooms, with no door between."
             yield [t, t + 1], why
+
+
+def _positions(ssh_map: SSHMap) -> dict[int | None, complex]:
+    """The position of the first dstate of each place, in metres."""
+    poses = ssh_map.fit.poses if ssh_map.fit else ()
+    every = [*zip(ssh_map.dstates, poses, strict=False)]
+    return {state.place: complex(pose.x, pose.y) for state, pose in reversed(every)}
+
+
+def _along(line: Sequence[Point], z: complex) -> tuple[float, float]:
+    """How far the nearest point of a line to a point is along it, and how far others may be.
+
+    These are at most NEAR metres farther from the point than the nearest one.
+    """
+    found, length = [(0.0, 0.0)], 0.0
+    for a, b in pairwise(complex(*point) for point in line):
+        side = abs(b - a)
+        share = min(max(((z - a) * (b - a).conjugate()).real / max(side, 1e-9) ** 2, 0.0), 1.0)
+        found.append((abs(z - a - share * (b - a)), length + share * side))
+        length += side
+    off, metres = min(found[1:] or found)
+    return metres, math.sqrt((off + NEAR) ** 2 - off**2)
