@@ -91,6 +91,7 @@ def test_typos_of_things_name_what_is_near(
         (["name", maps, "regoin1", "x"], "did you mean region1"),
         (["name", maps, "1", "x"], "write p1, d1 or monday:1"),
         (["name", maps, "wing0", "x"], "a wing has no name: name its corridor"),
+        (["name", maps, "junction0", "x"], "a junction has no name: name one of its places"),
     ):
         assert main(words) == 1
         assert said in capsys.readouterr().err

@@ -481,6 +481,7 @@ def test_maps_say_what_they_cannot_have() -> None:
     for wrong, why in (
         (replace(ssh_map, fit=None), "no poses"),
         (with_one_place(ssh_map), "one place"),
+        (replace(with_one_place(ssh_map), fit=None), "one place"),
     ):
         found = with_building(wrong, trace)
         assert found.building

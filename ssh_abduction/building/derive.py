@@ -85,7 +85,8 @@ def buildings_of(ssh_map: SSHMap, trace: Trace, most: int = 0) -> Iterator[SSHMa
     checked_map(ssh_map)
     check_of_trace([ssh_map], checked_trace(trace), "map", views=False)
     if not ssh_map.places or not ssh_map.fit or not ssh_map.fit.poses:
-        note = (ONLY_THEORY if ssh_map.paths else NO_POSES) if ssh_map.places else NO_PLACES
+        note = NO_TRAVEL if len(ssh_map.places) == 1 else NO_POSES if ssh_map.places else NO_PLACES
+        note = ONLY_THEORY if ssh_map.paths else note
         yield replace(ssh_map, building=Indoors(notes=(note,)), paths=_theory_paths(ssh_map))
         return
     plan = FloorPlan.of(ssh_map, trace)

@@ -487,6 +487,7 @@ class SavedMap:
             names = self.given | {f"{kind}{n}" for kind in NAMED for n in re.findall(r"\d+$", text)}
             hint = meant(text, names, 3) or "; or a place, corridor, room or door, such as room4"
             hint += "; a wing has no name: name its corridor" * ("wing" in text)
+            hint += "; a junction has no name: name one of its places" * ("junction" in text)
             raise MapError(f"{error}{hint}") from None
 
     @property
