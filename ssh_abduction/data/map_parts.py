@@ -133,8 +133,8 @@ class Name:
     """A name that a person gave.
 
     Attributes:
-        kind: What has the name: "place", "path" or "region".
-        id: The number of the place, path or region.
+        kind: What has the name: "place", "path", "region", "corridor", "room" or "door".
+        id: Its number.
         text: The name.
     """
 
