@@ -800,6 +800,15 @@ def test_misread_view_is_suspected(tmp_path: Path) -> None:
     assert [*false_costs(doubtful.trace, answer, doubtful.maps, doubtful.theory)] == []
 
 
+def test_either_of_two_visits_may_be_misread() -> None:
+    known, rival = Rival(9.0, (0, 1, 2, 3, 3, 4)), Rival(9.0, (0, 1, 0, 2, 2, 2), (), True)
+    rival = replace(rival, faults=(("misread", 2), ("misread", 5)))
+    weighed = Weighed(9.0, 0.0, (known, rival), True)
+    assert "steps 0 or 2 and 5 may be misread: with misread allowed the map has 3" in (
+        weighed.sentence
+    )
+
+
 def test_online_mapper_refuses_weigh_cost() -> None:
     with pytest.raises(TheoryError, match="weigh: expected count while a robot drives"):
         OnlineMapper("a", Theory(weigh="cost"))

@@ -14,10 +14,10 @@ from itertools import pairwise
 from typing import Any
 
 from ssh_abduction.data.drives import Drive, named_steps
-from ssh_abduction.data.groups import indices_of
+from ssh_abduction.data.groups import gathered, indices_of
 from ssh_abduction.data.map_parts import FAULTS
 from ssh_abduction.data.schema import FieldReader
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import counted, noun_of
 
 EQUAL = 1e-6  # costs in nats that differ by less count as equal
 # Probabilities with the same digits are equally doubtful. A file has costs with fewer digits, and
@@ -281,7 +281,7 @@ class Weighed:
         """Which steps may be misread, by the most probable rival that says so; "" if none does."""
         best, known = self.rivals[0], {*self.rivals[0].faults}
         said = [
-            (weight, rival, [t for kind, t in rival.faults if (kind, t) not in known])
+            (weight, rival, sorted(t for kind, t in rival.faults if (kind, t) not in known))
             for weight, rival in zip(self.weights, self.rivals, strict=True)
             if rival.estimated and any(kind == "misread" for kind, _ in {*rival.faults} - known)
         ]
@@ -289,10 +289,12 @@ class Weighed:
         if weight < DOUBTED:
             return ""
         names = named_steps(self.drives, len(best.dstates))
-        *others, last = (str(names[t]) for t in sorted(wrong))
-        steps = f"steps {', '.join(others)} and {last}" if others else f"step {last}"
+        # Of two visits, either may be misread.
+        visits = gathered((dstate, t) for t, dstate in enumerate(rival.dstates))
+        either = (seen if len(seen := visits[rival.dstates[t]]) == 2 else [t] for t in wrong)
+        told = " and ".join(" or ".join(str(names[t]) for t in some) for some in either)
         return (
-            f"; {steps} may be misread: with misread allowed the map has "
+            f"; {noun_of('step', wrong)} {told} may be misread: with misread allowed the map has "
             f"{len({*rival.dstates})} dstates instead of {len({*best.dstates})}"
         )
 
