@@ -212,6 +212,7 @@ EDGE = {"source": "a", "action": "east", "target": "b"}
 @pytest.mark.parametrize(
     ("graph", "said"),
     [
+        (None, "expected JSON, got an empty file; write JSON"),
         ([], "expected a graph with edges, got []"),
         ({"nodes": []}, "expected a graph with edges"),
         (["a"], "edge 1: expected an object such as"),
@@ -228,7 +229,7 @@ def test_bad_graphs_get_one_clear_line(
     graph: object, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "graph.json"
-    file.write_text(json.dumps(graph))
+    file.write_text("" if graph is None else json.dumps(graph))
     assert main(["repair", str(file)]) == 1
     error = capsys.readouterr().err
     assert said in error

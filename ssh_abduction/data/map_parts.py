@@ -437,10 +437,11 @@ def read_json(path: str | os.PathLike[str], what: str = "file of maps") -> Any:
     with opened_file(path, f"a readable {what}", MapError) as file:
         text = file.read(LARGEST + 1)
     fewer = "list fewer (solve --maps)"
+    mend = FieldReader.mend if what == "file of maps" else "write JSON"
     if len(text) > LARGEST:
         raise MapError(f"{source}: expected at most {LARGEST // 2**20} MiB, got more; {fewer}")
     if not text.strip():
-        raise MapError(f"{source}: expected JSON, got an empty file; {FieldReader.mend}")
+        raise MapError(f"{source}: expected JSON, got an empty file; {mend}")
     try:
         return parse_json(text)
     except MemoryError:
@@ -450,8 +451,7 @@ def read_json(path: str | os.PathLike[str], what: str = "file of maps") -> Any:
     except BadJson as error:
         if text.startswith(b'{"format": "ssh-trace"'):
             raise MapError(
-                f"{source}: expected maps, got a trace; "
-                f"name the two files in the other order, or solve it first"
+                f"{source}: expected maps, got a trace; swap the two files, or solve it first"
             ) from None
         where = source if error.line is None else f"{source}:{error.line}"
         if "Extra data" in str(error):
@@ -460,8 +460,8 @@ def read_json(path: str | os.PathLike[str], what: str = "file of maps") -> Any:
                 "solve prints a line for each of several traces: take one of them"
             ) from None
         where += f": {error.field}" if error.field else ""
-        mend = error.mend or (FieldReader.mend if what == "file of maps" else "write JSON")
-        raise MapError(f"{where}: expected {error.expected}, got {error}; {mend}") from None
+        said = f"expected {error.expected}, got {error}; {error.mend or mend}"
+        raise MapError(f"{where}: {said}") from None
 
 
 def check_format(data: Mapping[str, Any], expected: str, where: str) -> None:
