@@ -255,6 +255,31 @@ def test_folder_that_cannot_be_written_is_told_once(
     assert "cannot be written" in line
 
 
+def test_a_new_drive_leaves_no_file_of_the_last_one_beside_it(
+    scans: tuple[Scan, ...], tmp_path: Path
+) -> None:
+    said: list[str] = []
+    session = LiveSession(OnlineLogMapper(), tmp_path, said.append)
+    session.restart(OnlineLogMapper())  # nothing was saved yet
+    assert not [*tmp_path.iterdir()]
+    for drive in (1, 2):
+        session.page = b"old"
+        (tmp_path / "page.html").write_text(f"map of drive {drive}")
+        for scan in scans[: 3 * drive]:
+            session.take(scan)
+        session.restart(OnlineLogMapper())
+        assert session.page is None
+        assert not OnlineLogMapper.is_saved(tmp_path)
+        aside = tmp_path / f"before-{drive}"
+        assert len(OnlineLogMapper.load(aside)) == 3 * drive
+        assert (aside / "page.html").read_text() == f"map of drive {drive}"
+    assert {file.name for file in tmp_path.iterdir()} == {"before-1", "before-2"}
+    session.take(scans[0])
+    session.save()
+    assert len(OnlineLogMapper.load(tmp_path)) == 1
+    assert not said
+
+
 def test_replay_keeps_the_folder_of_another_program(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

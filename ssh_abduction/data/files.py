@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
+from itertools import count
 from pathlib import Path
 from string import Template
 from typing import Any, BinaryIO
@@ -240,6 +241,15 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> None:
     finally:
         with suppress(OSError):  # if the folder does not exist, or is a file
             draft.unlink(missing_ok=True)
+
+
+def retire(folder: Path | None) -> None:
+    """Move the files of a folder into a new folder `before-N` in it. Raises OSError."""
+    if folder and (files := [file for file in folder.glob("*") if file.is_file()]):
+        aside = next(p for n in count(1) if not (p := folder / f"before-{n}").exists())
+        aside.mkdir()
+        for file in files:
+            file.rename(aside / file.name)
 
 
 def mend_of(error: OSError) -> str:

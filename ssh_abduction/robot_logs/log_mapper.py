@@ -36,7 +36,7 @@ from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.checks import an_instance, one_of
 from ssh_abduction.data.corrections import Corrections, Naming
 from ssh_abduction.data.errors import named
-from ssh_abduction.data.files import json_line, mend_of, parse_json, read_file, write_file
+from ssh_abduction.data.files import json_line, mend_of, parse_json, read_file, retire, write_file
 from ssh_abduction.data.groups import first_index_of, indices_of
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.trace import Trace
@@ -550,8 +550,7 @@ class OnlineLogMapper:
             )
         mapper.said, mapper.sure = data["said"], data["sure"]
         for field_name, value in data["names"].items():
-            by_number = isinstance(value, dict)
-            kept = {int(key): one for key, one in value.items()} if by_number else value
+            kept = {int(k): one for k, one in value.items()} if isinstance(value, dict) else value
             setattr(mapper._names, field_name, kept)
         return mapper
 
@@ -591,10 +590,9 @@ class MapSearch:
 
     def taken(self, wait: float = 0.0) -> FoundMap | None:
         """Take the result, if there is one within `wait` seconds; None if there is none."""
-        if self._thread is None:
-            return None
-        self._thread.join(wait)
-        if self._thread.is_alive():
+        if self._thread is not None:
+            self._thread.join(wait)
+        if self._thread is None or self._thread.is_alive():
             return None
         self._thread = None
         return self._found[0] if self._found else None
@@ -637,10 +635,9 @@ class LiveSession:
         pose = self.seen.pose
         if not self.trail or math.dist(self.trail[-1][1][:2], pose[:2]) > TRAIL:
             self.trail.append((len(self.mapper) - 1, pose))
-        was_on_map = before is not None and before.on_map is not None
-        if self.seen.on_map is not None and not was_on_map:
+        if self.seen.on_map is not None and (before is None or before.on_map is None):
             x, y, _ = self.seen.on_map
-            self._tell(f"the robot is located at ({x:.1f}, {y:.1f}) on the map")
+            self.happened(f"the robot is located at ({x:.1f}, {y:.1f}) on the map")
         return self.seen
 
     def tick(self, wait: float = 0.0) -> bool:
@@ -649,7 +646,7 @@ class LiveSession:
         if error := self._search.error:
             self._search.error, text = "", f"no new map: {error}"
             if text not in self.events[-1:]:
-                self._tell(text)
+                self.happened(text)
         if found is not None:
             for event in self.mapper.accept(found):
                 self.happened(event)
@@ -665,18 +662,18 @@ class LiveSession:
             self.told = self.mapper.to_dict()
         return is_new
 
-    def happened(self, event: Event) -> None:
+    def happened(self, event: object) -> None:
         """Say an event, and keep it for pages and topics."""
-        self._tell(str(event))
-
-    def _tell(self, text: str) -> None:
-        self.events.append(text)
-        self._say(text)
+        self.events.append(str(event))
+        self._say(str(event))
 
     def restart(self, mapper: OnlineLogMapper) -> None:
-        """Begin a new drive. The search ends, and the next save replaces the old state."""
+        """Begin a new drive. The search ends, and all files move to `before-N` in the folder."""
         self._search.end()
-        self.mapper, self.seen, self.told = mapper, None, mapper.to_dict()
+        self.save()
+        with self._told():
+            retire(self.folder)
+        self.mapper, self.seen, self.told, self.page = mapper, None, mapper.to_dict(), None
         self.scan, self.trail, self.ground, self.maps = None, [], {}, 0
 
     def save(self) -> None:

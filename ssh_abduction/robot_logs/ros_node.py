@@ -287,8 +287,7 @@ class LiveNode:
         fixed, moving = (partial(self._on_frames, is_static=static) for static in (True, False))
         self.node.create_subscription(TFMessage, "/tf_static", fixed, latched)
         if self._by_frames:
-            topic = str(self._value("odom_topic"))
-            self.node.create_subscription(TFMessage, topic, moving, DEEP)
+            self.node.create_subscription(TFMessage, self._value("odom_topic"), moving, DEEP)
 
     def _on_frames(self, message: Any, is_static: bool) -> None:
         for one in message.transforms:
@@ -361,8 +360,7 @@ class LiveNode:
             self._work()
 
     def _mount_of(self, message: Any) -> Mount | None:
-        may_wait = time.monotonic() - self._begun < PATIENCE
-        return self._frames.mount(message, may_wait, self._once)
+        return self._frames.mount(message, time.monotonic() - self._begun < PATIENCE, self._once)
 
     def _work(self) -> None:
         for at, message, pose in self.pairing.ready(lambda one: self._mount_of(one) is not None):
@@ -386,8 +384,7 @@ class LiveNode:
         for text in self.session.events[self._told_events :]:
             self._topics["events"].publish(String(data=text))
         self._told_events = len(self.session.events)
-        if self.session.seen is not None:
-            seen = self.session.seen
+        if (seen := self.session.seen) is not None:
             said = {"pose": seen.pose, "on_map": seen.on_map, "belief": seen.belief}
             self._topics["belief"].publish(String(data=json.dumps(said)))
 
@@ -438,8 +435,7 @@ class LiveNode:
 
     def _save(self, _: Any) -> str:
         self.session.save()
-        found = self.session.mapper.to_dict()
-        return json.dumps({**found, "lost": dict(self.pairing.lost)})
+        return json.dumps({**self.session.mapper.to_dict(), "lost": dict(self.pairing.lost)})
 
     def _reset(self, _: Any) -> str:
         self.session.restart(self._new_mapper())

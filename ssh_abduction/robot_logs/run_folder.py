@@ -51,8 +51,7 @@ def bring_up_to_date(maps: Path, change: Literal["names", "corrections", "maps"]
             kept = [section for section in ground.sections if section.title == OF_LOG]
             ground = replace(ground, sections=(Section("Summary", (SOLVED,)), *kept))
         if all(step.image is not None for step in trace.steps):
-            recogniser = recogniser_file(trace, solution.maps[0])
-            write_file(folder / "recogniser.skops", recogniser)
+            write_file(folder / "recogniser.skops", recogniser_file(trace, solution.maps[0]))
         else:
             (folder / "recogniser.skops").unlink(missing_ok=True)
         fields = json.loads(run.read_text(encoding="utf-8"))
