@@ -44,6 +44,7 @@ from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.sources.metric.beam import Beam, Extending
 from ssh_abduction.solver.sources.metric.hypothesis import Pieces, headings_by_turn
+from ssh_abduction.solver.sources.metric.joint_drives import Joining
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 
@@ -436,6 +437,16 @@ def test_places_of_joined_drives_are_merged_further() -> None:
     known = cut(next(truth.aces3([97501], truth.noise_of(Odometry(), 97501))), 3, 4)
     found = solve(known.trace, Theory.topological().replace(star="none"), work_limit=4.0)
     assert truth.is_true(found.maps[0], known)
+
+
+@pytest.mark.parametrize(("seed", "star"), [(160006, "none"), (124000, "auto")])
+def test_drives_are_joined_with_one_other_decision(seed: int, star: str) -> None:
+    """The cheapest first join is false (160006), or the map of the first drive alone (124000)."""
+    known = cut(next(truth.aces3([seed], truth.noise_of(Odometry(), seed))), 3, 4)
+    problem = settle(known.trace, Theory.topological().replace(star=star))
+    joining = Joining(problem, Log(problem.trace, problem.theory, problem.pairs))
+    assert not any(truth.is_true(found, known) for found in joining.maps())
+    assert any(truth.is_true(found, known) for found in joining.others())
 
 
 @pytest.mark.filterwarnings("ignore:views. trace")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -99,10 +99,10 @@ class Candidates:
             self._beams[key] = Beam(problem, self._task.log, width)
         return self._beams[key]
 
-    def maps_of(self, search: Beam | Joining) -> Iterator[SSHMap]:
-        """Yield the maps that a search finds and the checker accepts, in its order."""
-        maps = (projected(ssh_map, self._task.theory) for ssh_map in search.maps())
-        yield from filter(self._judging.accepts, maps)
+    def accepted(self, maps: Iterable[SSHMap]) -> Iterator[SSHMap]:
+        """Yield the maps that the checker accepts."""
+        projections = (projected(ssh_map, self._task.theory) for ssh_map in maps)
+        yield from filter(self._judging.accepts, projections)
 
     def accepts(self, ssh_map: SSHMap) -> bool:
         """Whether the checker accepts a map."""

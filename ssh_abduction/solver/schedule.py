@@ -108,6 +108,12 @@ WEIGHED = (
         until=0.5,
     ),
     SourceTurn(
+        "other joint maps",
+        "the same",
+        "What fits best for one drive or two may be false, and only the other drives tell.",
+        share=0.5,
+    ),
+    SourceTurn(
         "beam of 1",
         "up to 2,000 steps, unless joining drives gave one piece",
         "It finds most true maps.",

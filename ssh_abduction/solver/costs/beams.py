@@ -11,7 +11,7 @@ Closures may be false. Places are merged under several explanations of the closu
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Set
 from contextlib import suppress
 from dataclasses import replace
 
@@ -69,6 +69,7 @@ class Beams:
         self._ended: Beam | None = None  # the widest beam that ended
         self._whole: Set[int] | None = None  # the closures of a beam that dropped nothing
         self._first = math.inf  # the time of the first beam
+        self._joining: Joining | None = None  # the joint drives, once they are joined
         self._has_joined = False  # whether the maps of single drives gave a map of one piece
 
     def found(self, nats: float) -> bool:
@@ -113,6 +114,7 @@ class Beams:
             Source(turn("smoothing"), lambda: True, self._smooth),
             Source(turn("false closures"), self._doubts_closures, self._sort_closures),
             Source(turn("joint drives"), lambda: several, self._join),
+            Source(turn("other joint maps"), lambda: several, self._join_otherwise),
             *map(beam, widths),
             Source(
                 turn("beam without axioms"),
@@ -156,10 +158,22 @@ class Beams:
     def _join(self) -> None:
         """Join the maps of single drives."""
         if (joining := self._parts.candidates.joining()) is not None:
-            maps = self._maps_of(joining)
+            maps = self._all_of(joining.maps())
             nats = min(maps, default=math.inf)
             self._take(nats, -math.inf, joining.broken)
             self._has_joined = bool(maps) and len(maps[nats].pieces) == 1
+            self._joining = joining
+
+    def _join_otherwise(self) -> None:
+        """Join drives in other ways, and merge the places of the best maps."""
+        if (joining := self._joining) is None:
+            return
+        candidates = self._parts.candidates
+        for found in candidates.accepted(joining.others()):
+            if (nats := self._add(found)) < self._nats() + TRIED:
+                merged = candidates.smoothed(self._misfit.beginning(found))
+                nats = min(nats, self._add(merged) if merged else math.inf)
+            self._take(nats, -math.inf, joining.broken)
 
     def _sort_closures(self) -> None:
         """Merge places under several explanations of the closures."""
@@ -210,7 +224,7 @@ class Beams:
 
     def _finish(self, beam: Beam, width: int) -> None:
         """Keep the maps that a beam ends with. Raises StageTimeError if it does not end in time."""
-        nats = min(self._maps_of(beam), default=math.inf)
+        nats = min(self._all_of(beam.maps()), default=math.inf)
         self._ended = beam
         if width < BROAD and beam.drops:
             return
@@ -219,13 +233,13 @@ class Beams:
         estimate = beam.hypotheses[0].nats if beam.hypotheses else math.inf
         self._take(nats, estimate, broken)
 
-    def _maps_of(self, guess: Beam | Joining) -> dict[float, SSHMap]:
-        """Keep the maps of a guess, and merge the places of the best ones. Return all by cost.
+    def _all_of(self, maps: Iterable[SSHMap]) -> dict[float, SSHMap]:
+        """Keep maps, and merge the places of the best ones. Return all by cost.
 
-        Raises StageTimeError if the guess does not end in time.
+        Raises StageTimeError if the maps are not all found in time.
         """
         candidates = self._parts.candidates
-        found = {self._add(one): one for one in candidates.maps_of(guess)}
+        found = {self._add(one): one for one in candidates.accepted(maps)}
         with suppress(StageTimeError):
             for nats in [nats for nats in sorted(found) if nats < min(found) + TRIED]:
                 merged = candidates.smoothed(self._misfit.beginning(found[nats]))

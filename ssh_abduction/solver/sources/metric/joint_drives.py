@@ -9,6 +9,8 @@ one map is turned. It is good if many other places then coincide with places tha
 
 The two maps with the best anchor are joined first: `overlay.py` merges the places and dstates that
 coincide. Then the joint map may be joined to others. Maps that no anchor connects stay pieces.
+A drive alone, or two, may fit better in a wrong way. So then one of these decisions is taken
+otherwise, and the others as before (limited discrepancy search).
 
 New drives may be laid on the map of old drives (`ExistingMap`). Each piece of this map must be
 kept, but pieces may be joined to each other. The old drives are given by a *digest*: a trace in
@@ -16,9 +18,10 @@ which each link of their map occurs once (`solver/onto.py`). The displacements o
 fitted to the map. The fit gives the joint Gaussian distribution of the poses, and each link of the
 digest gets the displacement between the poses of its ends.
 
-Reference:
+References:
     Carpin 2008, "Fast and accurate map merging for multi-robot systems" (votes for a turn and a
     shift).
+    Harvey & Ginsberg 1995, "Limited discrepancy search".
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.drives import Drive, drives_of
-from ssh_abduction.data.groups import numbered
+from ssh_abduction.data.groups import firsts, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
@@ -77,8 +80,6 @@ _Anchors: TypeAlias = dict[_Pair, list[_Anchor]]
 
 # The width of the beam that maps each drive alone.
 ALONE = 4
-# List this many other ways to join drives.
-OTHERS = 2
 # Two dstates may coincide if their headings differ by less than this many radians, and their
 # positions by less than this share of a usual travel.
 TURNED, SHIFTED = 0.4, 0.4
@@ -86,8 +87,8 @@ TURNED, SHIFTED = 0.4, 0.4
 VOTED = 64
 # Try this many of the best ways that lay two places on each other.
 CROSSED = 8
-# Begin with each of the STARTS pairs of drives that have the best anchors.
-STARTS = 3
+# Where one decision is another one, try only the FEW best ways to lay each two maps.
+FEW = 4
 
 
 class Joining:
@@ -101,6 +102,10 @@ class Joining:
         """Prepare the search. `maps` runs it."""
         self.broken = 0.0
         self._problem, self._log = problem, log
+        self._most = VOTED + CROSSED  # ways to try for each two maps
+        # The maps that `maps` begins with; and maps of drives, each with another map of its drive.
+        self._known: list[Hypothesis] = []
+        self._others: list[tuple[Hypothesis, Hypothesis]] = []
         self._bare = problem.theory.replace(displacement="none", weigh="count")
         self.sights = Sights(problem.trace, self._bare)
         # The ways to lay one map on another.
@@ -112,7 +117,6 @@ class Joining:
         """Yield a map in which no drives are joined, and last the cheapest map found.
 
         If the cheapest map has pieces, also yield the cheapest map in which two of them are joined.
-        Also yield maps like the cheapest one in which drives lie otherwise on others.
         The caller has to check all maps. If `standing` is not empty, it has the pieces of a map of
         the first drives. Each piece must be kept.
         """
@@ -122,30 +126,37 @@ class Joining:
         known = [part for part in found if part is not None]
         if len(known) < len(found):
             return
-        alone = [*standing, *self._connected(known)]
-        anchors = {
-            (first, second): self._anchors(first, second)
-            for first, second in combinations(alone, 2)
-        }
-        # The first join decides which others fit. So begin with each of the best pairs.
-        starts = sorted(anchors, key=lambda pair: anchors[pair][:1], reverse=True)[:STARTS]
-        joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
-        best = min(joined, key=_nats_of, default=alone)
+        self._known = alone = [*standing, *self._connected(known)]
+        best = self._all_joined(alone)
         if len(best) < len(alone):
             yield from self._beside(alone)
-        # Rivals of the best map: two more pieces joined, and drives laid in other ways.
+        # A rival of the best map: two more pieces joined.
         dearer = []
         for two in combinations(best, 2):
             pair = two[::-1] if two[::-1] in self._laid else two
-            if (both := self._joined(*pair, math.inf)) is not None:
+            if (both := next(self._joins(*pair, math.inf), None)) is not None:
                 dearer.append([*(part for part in best if part not in pair), both])
         if dearer:
             yield from self._beside(min(dearer, key=_nats_of))
-        for part in best:
-            rest = [other for other in best if other is not part]
-            for otherwise in self._otherwise(part):
-                yield from self._beside([*rest, otherwise])
         yield from self._beside(best)
+
+    def others(self) -> Iterator[SSHMap]:
+        """Yield maps in which one decision is another one than in `maps`, which was called before.
+
+        This is the first way in which two maps are joined, and then the map of one drive alone, at
+        other places. What costs least comes first.
+        """
+        self._most = FEW
+        for drive, other in [(None, None), *self._others]:
+            parts = [other if other and part is drive else part for part in self._known]
+            begun = dict[object, list[Hypothesis]]()
+            for pair in combinations(parts, 2):
+                rest = [part for part in parts if part not in pair]
+                ways = self._joins(*pair, _nats_of(pair)) if other in (None, *pair) else ()
+                for both in ways:
+                    begun.setdefault((_course(both), *map(_course, rest)), [both, *rest])
+            for after in sorted(begun.values(), key=_nats_of):
+                yield from self._beside(self._all_joined(after))
 
     def _connected(self, alone: list[Hypothesis]) -> list[Hypothesis]:
         """Map drives together that closures connect, if that costs less and breaks no axiom.
@@ -163,19 +174,17 @@ class Joining:
                 alone = [*(part for part in alone if part not in parts), both]
         return alone
 
-    def _all_joined(
-        self, parts: list[Hypothesis], anchors: _Anchors, start: _Pair
-    ) -> list[Hypothesis]:
-        """Join maps: first the pair `start`, then pairs with the best anchor (way to lay them)."""
-        pair = start
+    def _all_joined(self, parts: list[Hypothesis]) -> list[Hypothesis]:
+        """Join the two maps with the best anchor (way to lay them) as long as any can be joined."""
+        anchors = {pair: self._anchors(*pair) for pair in combinations(parts, 2)}
         while anchors:
+            pair = max(anchors, key=lambda pair: anchors[pair][:1])
             del anchors[pair]
-            if (joined := self._joined(*pair, _nats_of(pair))) is not None:
+            if (joined := next(self._joins(*pair, _nats_of(pair)), None)) is not None:
                 parts = [part for part in parts if part not in pair]
                 anchors = {two: ways for two, ways in anchors.items() if not {*two} & {*pair}}
                 anchors |= {(joined, part): self._anchors(joined, part) for part in parts}
                 parts.append(joined)
-            pair = max(anchors, key=lambda pair: anchors[pair][:1], default=start)
         return parts
 
     def _beside(self, parts: Sequence[Hypothesis]) -> Iterator[SSHMap]:
@@ -195,10 +204,12 @@ class Joining:
         beam = Beam(problem, Log(trace, theory, problem.pairs), ALONE)
         if next(beam.maps(), None) is None:
             return None
-        best = beam.hypotheses[0]
+        at_places = firsts((_course(found)[1], found) for found in beam.hypotheses)
         if beam.refuses:
-            self.broken += best.nats - beam.nats_without_axioms()
-        return self._of_drive(best, drive.first)
+            self.broken += beam.hypotheses[0].nats - beam.nats_without_axioms()
+        best, *others = (self._of_drive(found, drive.first) for found in at_places.values())
+        self._others += ((best, other) for other in others)
+        return best
 
     def _of_drive(self, found: Hypothesis, first: int) -> Hypothesis:
         """Return a hypothesis about a drive alone as one about the steps of the whole trace."""
@@ -280,36 +291,17 @@ class Joining:
         least = 1 if same.sum() == 1 else 2
         return sorted((way for way in found if way.good >= least), reverse=True)[:CROSSED]
 
-    def _joined(self, first: Hypothesis, second: Hypothesis, most: float) -> Hypothesis | None:
-        """Join two maps in the cheapest way that breaks no axiom and costs less than `most` nats.
-
-        None if there is no such way.
-        """
+    def _joins(self, first: Hypothesis, second: Hypothesis, most: float) -> Iterator[Hypothesis]:
+        """Join two maps in the ways that break no axiom and cost less than `most` nats."""
         overlay = Overlay(first, second, self._problem, self.sights)
         if (first, second) not in self._laid:
-            laid = ((_laid(overlay, way), way) for way in self._anchors(first, second))
+            ways = self._anchors(first, second)[: self._most]
+            laid = ((_laid(overlay, way), way) for way in ways)
             told = [(part.nats, way) for part, way in laid if part]
             self._laid[first, second] = sorted(told, key=lambda told: told[0])
         cheap = (way for nats, way in self._laid[first, second] if nats < most)
         joined = (_laid(overlay, way) for way in cheap)
-        return next((part for part in joined if part and self._map(part)), None)
-
-    def _otherwise(self, part: Hypothesis) -> Iterator[Hypothesis]:
-        """Yield parts with the same drives, joined in the next cheapest ways."""
-        ways = [
-            (nats, pair, way)
-            for pair, found in self._laid.items()
-            for nats, way in found
-            if {*pair[0].labels, *pair[1].labels} == {*part.labels}
-        ]
-        known = [_dstates(part)]
-        for _, pair, way in sorted(ways, key=lambda told: told[0]):
-            other = _laid(Overlay(*pair, self._problem, self.sights), way)
-            if other and (dstates := _dstates(other)) not in known and self._map(other):
-                yield other
-                known.append(dstates)
-                if len(known) > OTHERS:
-                    break
+        return (part for part in joined if part and self._map(part))
 
     def _map(self, part: Hypothesis) -> SSHMap | None:
         """Make the map of a part; None if it breaks an axiom."""
@@ -334,9 +326,10 @@ def _nats_of(parts: Iterable[Hypothesis]) -> float:
     return sum(part.nats for part in parts)
 
 
-def _dstates(part: Hypothesis) -> list[int]:
-    """Return the dstate of each step of a part, numbered by first visit."""
-    return numbered(part.labels[t] for t in sorted(part.labels))
+def _course(part: Hypothesis) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the dstate and the place of each step of a part, numbered by first visit."""
+    labels = [part.labels[t] for t in sorted(part.labels)]
+    return tuple(numbered(labels)), tuple(numbered(part.places[label] for label in labels))
 
 
 def _laid(overlay: Overlay, way: _Anchor) -> Hypothesis | None:
