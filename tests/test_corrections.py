@@ -87,7 +87,8 @@ def test_typos_of_things_name_what_is_near(
     maps = str(folder / "building" / "maps.json")
     for words, said in (
         (["explain", maps, "p0", "p99"], "p99: expected a place of the map"),
-        (["explain", maps, "p0", "pth1"], "step 'pth1': expected a step"),
+        (["explain", maps, "p0", "pth1"], "show lists all; did you mean path1"),
+        (["explain", maps, "p0", "x99y"], "step 'x99y': expected a step"),
         (["name", maps, "regoin1", "x"], "did you mean region1"),
         (["name", maps, "1", "x"], "write p1, d1 or monday:1"),
         (["name", maps, "wing0", "x"], "a wing has no name: name its corridor"),

@@ -485,10 +485,12 @@ class SavedMap:
             return "place", self.step(text)
         except MapError as error:
             names = self.given | {f"{kind}{n}" for kind in NAMED for n in re.findall(r"\d+$", text)}
-            hint = meant(text, names, 3) or "; or a place, corridor, room or door, such as room4"
-            hint += "; a wing has no name: name its corridor" * ("wing" in text)
+            near, said = meant(text, names, 3), f"name: expected one of this map, got {brief(text)}"
+            if not near:
+                said, near = str(error), "; or a place, corridor, room or door, such as room4"
+            hint = "; a wing has no name: name its corridor" * ("wing" in text)
             hint += "; a junction has no name: name one of its places" * ("junction" in text)
-            raise MapError(f"{error}{hint}") from None
+            raise MapError(f"{said}; ssh-abduction show lists all{near}{hint}") from None
 
     @property
     def given(self) -> set[str]:

@@ -411,10 +411,10 @@ def run_view(options: argparse.Namespace) -> int:
 
     options.trace = options.trace or shared.trace_beside(options.maps)
     trace = shared.mapped_trace(options.maps, options.trace)
-    _check(options, trace)
     data = read_json(options.maps)
     source = "standard input" if options.maps == "-" else options.maps
     listing = Listing.from_dict(data, source).named_beside(options.maps)
+    _check(options, trace)
     theory = shared.written_theory(data)
     maps = "maps.json" if options.maps == "-" else options.maps
     flags = [] if theory is None else ["--theory", maps]

@@ -58,7 +58,8 @@ def free_port(name: str, port: int, error: Kind) -> Iterator[None]:
         yield
     except (OSError, OverflowError) as wrong:
         raise error(
-            f"{name}: expected a free port, got {port} ({wrong}); name another one, or 0 for any"
+            f"{name}: expected a free port, got {port} "
+            f"({getattr(wrong, 'strerror', wrong)}); name another one, or 0 for any"
         ) from None
 
 
