@@ -202,7 +202,7 @@ def test_places_of_the_best_map_of_a_broad_beam_are_merged() -> None:
     parts = Parts(problem, Limits(), Speedups(), None, Start(), 0.0)
     weighing, beam = Weighing(parts), parts.candidates.beam(4)
     assert beam
-    with patch.object(Candidates, "maps_of", return_value=[split]):
+    with patch.object(Candidates, "accepted", return_value=[split]):
         weighing.beams._finish(beam, 4)
     assert weighing.best
     assert [weighing.best.map.place_of(t) for t in range(7)] == [0, 1, 1, 0, 0, 2, 1]

@@ -338,9 +338,9 @@ def laid(
 ) -> tuple[SSHMap, Weighed] | None:
     """Find a joint map of little cost that keeps each piece of the map of the old drives.
 
-    `trace` has the new drives, and the problem all drives. The result is the cheapest of up to
-    three maps, with its costs: in one the new drives are pieces of their own, and in the others
-    they are joined to the old ones. Pieces of the old map may be joined, too. None if no such map
+    `trace` has the new drives, and the problem all drives. The result is the cheapest of a few
+    maps, with its costs: in one the new drives are pieces of their own, and in the others they are
+    joined to the old ones. Pieces of the old map may be joined, too. None if no such map
     satisfies the axioms. The displacements of the first `since` steps are known to agree with the
     map.
     """

@@ -29,7 +29,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import combinations, islice, pairwise
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -89,6 +89,8 @@ VOTED = 64
 CROSSED = 8
 # Where one decision is another one, try only the FEW best ways to lay each two maps.
 FEW = 4
+# List this many other ways to lay new drives on an existing map.
+OTHERS = 2
 
 
 class Joining:
@@ -409,12 +411,14 @@ class ExistingMap:
     def maps(self, problem: Problem, labels: Sequence[int]) -> Iterator[SSHMap]:
         """Yield maps of a digest and new drives. They keep the pieces of this map.
 
-        The cheapest one is last. The caller has to check them. The trace of the problem is a digest
+        The caller has to check them. The trace of the problem is a digest
         of the old drives, and then the new ones. `labels` has the dstate of each step of the
         digest.
         """
         log = Log(problem.trace, problem.theory, problem.pairs)
         joining = Joining(problem, log)
         parts = parts_of(self._fitted, labels, self._places, log, joining.sights, self._piece)
-        yield from joining.maps([replace(part, nats=0.0) for part in parts])  # they must be kept
+        found = [*joining.maps([replace(part, nats=0.0) for part in parts])]  # they must be kept
+        others = islice(joining.others(), OTHERS)
+        yield from (*found, *(other for other in others if other not in found))
         self.broken = joining.broken
