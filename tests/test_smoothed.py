@@ -17,6 +17,7 @@ from ssh_abduction.data import Closure, Odometry
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.robot_logs import log_maps
+from ssh_abduction.runtime.limits import StageTimeError
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.costs import beams
@@ -189,6 +190,19 @@ def test_search_takes_the_smoothed_map() -> None:
         weighing = guessed(Search(trace, BARE))
     assert weighing.best is not None
     assert is_true(weighing.best.map, places)
+
+
+def test_smoothed_map_is_kept_if_the_time_ends_before_its_cost_is_known() -> None:
+    trace = Trace.from_steps(
+        "abab", ["travel"] * 3, displacements=[(5.0, 0.0, math.pi)] * 3, odometry=Odometry()
+    )
+    parts = Parts(settle(trace, log_maps.BARE), Limits(), Speedups(), None, Start(), 0.0)
+    weighing = Weighing(parts)
+    late = patch.object(weighing.beams, "_add", side_effect=StageTimeError)
+    with late, pytest.raises(StageTimeError):
+        weighing.beams._smooth()
+    assert parts.known.best
+    assert len(parts.known.best.dstates) == 2
 
 
 def test_places_of_the_best_map_of_a_broad_beam_are_merged() -> None:

@@ -93,7 +93,7 @@ WEIGHED = (
         "smoothing",
         "displacements, no lifts, no faults within a drive but misread views without stars",
         "After a long way, poses that fit all closures are better than a beam.",
-        until=0.3,
+        until=0.5,
     ),
     SourceTurn(
         "false closures",
@@ -105,7 +105,7 @@ WEIGHED = (
         "joint drives",
         "several drives, no lifts, no faults within a drive but misread views without stars",
         "It takes a fifth of the work of a beam over all drives, which found no cheaper map.",
-        until=0.5,
+        until=0.6,
     ),
     SourceTurn(
         "other joint maps",

@@ -153,6 +153,7 @@ class Beams:
     def _smooth(self) -> None:
         """Merge places at poses that fit all closures."""
         if (smoothed := self._parts.candidates.smoothed()) is not None:
+            self._parts.candidates.offer(smoothed)  # its cost may take longer than this source may
             self._best = self._add(smoothed), math.inf
 
     def _join(self) -> None:
