@@ -81,7 +81,7 @@ def test_pose_graph_is_judged_by_the_closures_that_it_believes() -> None:
 
 def test_map_is_judged_by_its_dstates_and_places() -> None:
     drive = wings(0, odometry=EXACT)
-    solution = solve(replace(drive.trace, closures=()), THEORY, work_limit=0.3)
+    solution = solve(replace(drive.trace, closures=()), THEORY, work_limit=0.5)
     judged = judged_map(drive, solution)
     assert (judged.right, judged.wrong, judged.true, judged.listed) == (True, False, True, True)
     names = {name: number for number, name in enumerate(dict.fromkeys(drive.known.dstates))}
