@@ -340,9 +340,8 @@ def laid(
 
     `trace` has the new drives, and the problem all drives. The result is the cheapest of a few
     maps, with its costs: in one the new drives are pieces of their own, and in the others they are
-    joined to the old ones. Pieces of the old map may be joined, too. None if no such map
-    satisfies the axioms. The displacements of the first `since` steps are known to agree with the
-    map.
+    joined to the old ones. Pieces of the old map may be joined, too. None if no such map satisfies
+    the axioms. The displacements of the first `since` steps are known to agree with the map.
     """
     from ssh_abduction.solver.costs.misfit import Misfit  # loads numpy
     from ssh_abduction.solver.sources.metric.joint_drives import ExistingMap

@@ -169,11 +169,10 @@ class Beams:
         """Join drives in other ways, and merge the places of the best maps."""
         if (joining := self._joining) is None:
             return
-        candidates = self._parts.candidates
-        for found in candidates.accepted(joining.others()):
-            if (nats := self._add(found)) < self._nats() + TRIED:
-                merged = candidates.smoothed(self._misfit.beginning(found))
-                nats = min(nats, self._add(merged) if merged else math.inf)
+        for found in self._parts.candidates.accepted(joining.others()):
+            nats = self._add(found)
+            if nats < self._nats() + TRIED:
+                nats = min((nats, *self._merge(found)))
             self._take(nats, -math.inf, joining.broken)
 
     def _sort_closures(self) -> None:
@@ -187,8 +186,7 @@ class Beams:
             course = dstates_and_places(found)
             if misfit.nats_of_course(*course, aliases=aliases) < self._nats() + TRIED:
                 self._add(found)
-                if (merged := candidates.smoothed(misfit.beginning(found))) is not None:
-                    self._add(merged)
+                self._merge(found)
 
     def _doubts_closures(self) -> bool:
         """Whether closures may be false. Those of a log are trusted until its map does not fit."""
@@ -239,14 +237,16 @@ class Beams:
 
         Raises StageTimeError if the maps are not all found in time.
         """
-        candidates = self._parts.candidates
-        found = {self._add(one): one for one in candidates.accepted(maps)}
+        found = {self._add(one): one for one in self._parts.candidates.accepted(maps)}
         with suppress(StageTimeError):
             for nats in [nats for nats in sorted(found) if nats < min(found) + TRIED]:
-                merged = candidates.smoothed(self._misfit.beginning(found[nats]))
-                if merged is not None:
-                    found[self._add(merged)] = merged
+                found |= self._merge(found[nats])
         return found
+
+    def _merge(self, ssh_map: SSHMap) -> dict[float, SSHMap]:
+        """Merge the places of a map further. Keep the new map, and return it by its cost."""
+        merged = self._parts.candidates.smoothed(self._misfit.beginning(ssh_map))
+        return {} if merged is None else {self._add(merged): merged}
 
     def _break_axioms(self) -> None:
         """Find `broken` with the widest beam that ended."""

@@ -244,9 +244,10 @@ class Weighing:
                 if self._misfit.nats_of_course(*course) < before + TRIED:
                     bare = course_completed(problem, self._misfit, *course)
                     merged = candidates.smoothed(self._misfit.beginning_at(*course))
-                    for found in (bare, merged):
-                        if found is not None and candidates.accepts(found):
-                            self.add(found)
+                    if bare is not None and candidates.accepts(bare):
+                        self.add(bare)
+                    if merged is not None:
+                        self.add(merged)
 
     def may_jump(self) -> bool:
         """Whether to search for wrong displacements: the trace is too long for a proof of them."""

@@ -104,7 +104,6 @@ class Joining:
         """Prepare the search. `maps` runs it."""
         self.broken = 0.0
         self._problem, self._log = problem, log
-        self._most = VOTED + CROSSED  # ways to try for each two maps
         # The maps that `maps` begins with; and maps of drives, each with another map of its drive.
         self._known: list[Hypothesis] = []
         self._others: list[tuple[Hypothesis, Hypothesis]] = []
@@ -148,17 +147,16 @@ class Joining:
         This is the first way in which two maps are joined, and then the map of one drive alone, at
         other places. What costs least comes first.
         """
-        self._most = FEW
         for drive, other in [(None, None), *self._others]:
             parts = [other if other and part is drive else part for part in self._known]
             begun = dict[object, list[Hypothesis]]()
             for pair in combinations(parts, 2):
                 rest = [part for part in parts if part not in pair]
-                ways = self._joins(*pair, _nats_of(pair)) if other in (None, *pair) else ()
+                ways = self._joins(*pair, _nats_of(pair), FEW) if other in (None, *pair) else ()
                 for both in ways:
                     begun.setdefault((_course(both), *map(_course, rest)), [both, *rest])
             for after in sorted(begun.values(), key=_nats_of):
-                yield from self._beside(self._all_joined(after))
+                yield from self._beside(self._all_joined(after, FEW))
 
     def _connected(self, alone: list[Hypothesis]) -> list[Hypothesis]:
         """Map drives together that closures connect, if that costs less and breaks no axiom.
@@ -176,13 +174,16 @@ class Joining:
                 alone = [*(part for part in alone if part not in parts), both]
         return alone
 
-    def _all_joined(self, parts: list[Hypothesis]) -> list[Hypothesis]:
-        """Join the two maps with the best anchor (way to lay them) as long as any can be joined."""
+    def _all_joined(self, parts: list[Hypothesis], tries: int | None = None) -> list[Hypothesis]:
+        """Join the two maps with the best anchor (way to lay them) as long as any can be joined.
+
+        `tries` is as in `_joins`.
+        """
         anchors = {pair: self._anchors(*pair) for pair in combinations(parts, 2)}
         while anchors:
             pair = max(anchors, key=lambda pair: anchors[pair][:1])
             del anchors[pair]
-            if (joined := next(self._joins(*pair, _nats_of(pair)), None)) is not None:
+            if (joined := next(self._joins(*pair, _nats_of(pair), tries), None)) is not None:
                 parts = [part for part in parts if part not in pair]
                 anchors = {two: ways for two, ways in anchors.items() if not {*two} & {*pair}}
                 anchors |= {(joined, part): self._anchors(joined, part) for part in parts}
@@ -293,11 +294,16 @@ class Joining:
         least = 1 if same.sum() == 1 else 2
         return sorted((way for way in found if way.good >= least), reverse=True)[:CROSSED]
 
-    def _joins(self, first: Hypothesis, second: Hypothesis, most: float) -> Iterator[Hypothesis]:
-        """Join two maps in the ways that break no axiom and cost less than `most` nats."""
+    def _joins(
+        self, first: Hypothesis, second: Hypothesis, most: float, tries: int | None = None
+    ) -> Iterator[Hypothesis]:
+        """Join two maps in the ways that break no axiom and cost less than `most` nats.
+
+        If they were not tried before, try only the `tries` best ways; all of them if it is None.
+        """
         overlay = Overlay(first, second, self._problem, self.sights)
         if (first, second) not in self._laid:
-            ways = self._anchors(first, second)[: self._most]
+            ways = self._anchors(first, second)[:tries]
             laid = ((_laid(overlay, way), way) for way in ways)
             told = [(part.nats, way) for part, way in laid if part]
             self._laid[first, second] = sorted(told, key=lambda told: told[0])
@@ -411,9 +417,8 @@ class ExistingMap:
     def maps(self, problem: Problem, labels: Sequence[int]) -> Iterator[SSHMap]:
         """Yield maps of a digest and new drives. They keep the pieces of this map.
 
-        The caller has to check them. The trace of the problem is a digest
-        of the old drives, and then the new ones. `labels` has the dstate of each step of the
-        digest.
+        The caller has to check them. The trace of the problem is a digest of the old drives, and
+        then the new ones. `labels` has the dstate of each step of the digest.
         """
         log = Log(problem.trace, problem.theory, problem.pairs)
         joining = Joining(problem, log)
